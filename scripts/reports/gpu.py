@@ -8,11 +8,9 @@ import math
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import tyro
 
@@ -20,14 +18,14 @@ import quadrl
 from quadrl.aircraft.rotors import GRAVITY
 from quadrl.base.files import write_json
 from quadrl.base.units import percent
-from quadrl.core.batch import Batch
-from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import Policy
 from quadrl.learning.config import TrainConfig
 from quadrl.learning.device import DeviceTraining, Learner
+from quadrl.learning.device_check import Differences, compare, seconds, step_seconds
 from scripts.reports import report
+from scripts.reports.report import grouped
 
 LATE = {"command_delay": (0.0, 0.04), "observation_delay": (0.0, 0.03), "mass": (0.9, 1.1)}
 LATE |= {"command_loss": (0.0, 2.0), "command_jitter": (0.0, 0.5), "noise": {"position": 0.01}}
@@ -51,14 +49,6 @@ FLIGHTS: dict[str, dict[str, Any]] = {
 }
 TIMED = ("hover", "body rates", "race", "full air", "uncertain", "navigation")
 AIRCRAFT = (4_096, 65_536, 1_048_576)
-COMPARED, STEPS = 256, 100
-"""Aircraft and control steps of a comparison."""
-EXACT, NEAR, LOOSE = 1e-6, 1e-5, 1e-3
-"""Largest differences, relative to 1 + the number: of flights in double precision, whose sines are
-others than the processor's; and of the motion after a step in single precision, of all but one
-aircraft in a hundred, without and with loops, which take roots of thrusts that are nearly zero."""
-NEAR_SOLIDS = 1.0
-"""Clearance [m] from which on MuJoCo has not flown an aircraft."""
 WIDE = {"hidden": (128, 128), "critic_hidden": (128, 128)}
 RACE = {
     **{"laps": 3, "flying": 0.95, "margin": 0.1, "crash_weight": 20.0, "miss_weight": 5.0},
@@ -90,94 +80,8 @@ def scenario(name: str) -> Scenario:
     return Scenario.of(own.pop("task"), **own, engine="free_flight")
 
 
-def differs(found: torch.Tensor, expected: Any) -> torch.Tensor:
-    """The largest difference of each row, relative to 1 + the number."""
-    own, other = found.double().cpu(), torch.as_tensor(expected).double().cpu()
-    return ((own - other).abs() / (1 + other.abs())).reshape(len(own), -1).amax(1)
-
-
-def check(name: str, device: str) -> dict[str, float]:
-    """Fly the same episodes on a device and on the processor; what differs.
-
-    Where starts are drawn on the processor, the first episode of each row is compared; and where
-    there are solids, until one is near, since MuJoCo flies on the processor from there on.
-    """
-    given = scenario(name), COMPARED, 7, device
-    exact, fast = Batch(*given, precision="float64"), Batch(*given, precision="float32")
-    environment = Environment(given[0], num_envs=COMPARED, seed=7)
-    environment.reset(), exact.reset(), fast.reset()
-    rng, found = np.random.default_rng(0), {"flags": 0.0, "double": 0.0, "single": 0.0, "ends": 0.0}
-    single: list[torch.Tensor] = []
-    same, solids = np.ones(COMPARED, dtype=bool), bool(environment.scene.solids)
-    for _ in range(STEPS):
-        action = rng.normal(0, 0.4, (COMPARED, environment.action_size)).astype(np.float32)
-        fast.table.copy_(exact.table)
-        fast.episodes.copy_(exact.episodes)
-        for batch in (exact, fast):
-            batch.action[0].copy_(torch.from_numpy(action))
-        now, done = exact.step(), environment.step(action)
-        near = fast.step()
-        if solids:
-            same &= environment.engine.clearance() > NEAR_SOLIDS
-        flags = np.stack([done.terminated, done.truncated, done.is_success, done.diverged])
-        own = torch.stack([now.terminated, now.truncated, now.success, now.diverged])
-        found["flags"] += float((own.cpu().numpy() != flags)[:, same].sum())
-        seen = np.concatenate(list(done.observation.values()), -1)
-        for own, expected in ((now.final, seen), (now.reward, done.reward)):
-            worst = differs(own, expected)[torch.from_numpy(same)].amax() if same.any() else 0.0
-            found["double"] = max(found["double"], float(worst))
-        flying, motion = ~(now.over | near.over), slice(exact.layout.motion)
-        single.append(differs(fast.table[motion].T, exact.table[motion].T)[flying.cpu()])
-        over = flags[:2].any(0)
-        found["ends"] += float((over & same).sum())
-        if exact.layout.pooled:
-            same &= ~over
-        if over.any():
-            environment.reset(over)
-    found["single"] = float(torch.cat(single).quantile(0.99))
-    return found
-
-
-def passes(name: str, found: dict[str, float]) -> bool:
-    """Whether a comparison shows no fault."""
-    near = LOOSE if scenario(name).control_mode != "rotor" else NEAR
-    return found["flags"] == 0 and found["double"] < EXACT and found["single"] < near
-
-
-def seconds(call: Callable[[], None], times: int) -> float:
-    """Time of a call, recorded as a graph, the median of seven rounds of some launches [s]."""
-    call()
-    torch.cuda.synchronize()
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        call()
-    graph.replay()
-    rounds: list[float] = []
-    for _ in range(7):
-        begun, ended = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-        begun.record()
-        for _ in range(times):
-            graph.replay()
-        ended.record()
-        ended.synchronize()
-        rounds.append(1e-3 * begun.elapsed_time(ended) / times)
-    return sorted(rounds)[3]
-
-
-def timed(name: str, count: int, steps: int = 20) -> dict[str, Any]:
-    """Control steps a second of a flight with random actions, episodes' starts included."""
-    batch = Batch(scenario(name), count, 0)
-    batch.reset()
-    batch.action.normal_(0, 0.3)
-    for _ in range(200):  # until some episodes of all lengths are over
-        batch.fly(0)
-
-    def fly() -> None:
-        for _ in range(steps):
-            batch.fly(0)
-
-    each = seconds(fly, 5) / steps
-    batch.check()
+def per_second(name: str, count: int, each: float) -> dict[str, Any]:
+    """A row of the speeds, from the time of a control step [s]."""
     return {"flight": name, "aircraft": count, "us": 1e6 * each, "steps_per_second": count / each}
 
 
@@ -187,8 +91,7 @@ def with_policy(count: int) -> dict[str, Any]:
         config = TrainConfig("hover", num_envs=count, device="cuda", evaluations=0)
         learner: Learner = DeviceTraining(config, Path(folder) / "run")._learner
         each = seconds(torch.no_grad()(learner._fly), 5) / config.rollout
-    name = "hover, policy of 128 neurons"
-    return {"flight": name, "aircraft": count, "us": 1e6 * each, "steps_per_second": count / each}
+    return per_second("hover, policy of 128 neurons", count, each)
 
 
 def trained(task: str, seed: int, runs: Path) -> dict[str, Any]:
@@ -263,19 +166,22 @@ def gpu(
         return
     if not torch.cuda.is_available():
         sys.exit("there is no GPU that this torch can use: nothing was measured")
-    checked: dict[str, dict[str, float]] = {}
+    checked: dict[str, Differences] = {}
     for name in FLIGHTS:
-        checked[name] = check(name, "cuda")
-        fine = "ok" if passes(name, checked[name]) else "FAILED"
-        print(f"{fine:7}{name:20}{json.dumps(checked[name])}", flush=True)
-    if not all(passes(*one) for one in checked.items()):
+        checked[name] = compare(flown := scenario(name), "cuda")
+        fine = checked[name].fine(flown.control_mode)
+        print(f"{'ok' if fine else 'FAILED':7}{name:20}{checked[name]}", flush=True)
+    if not all(each.fine(scenario(name).control_mode) for name, each in checked.items()):
         sys.exit("the GPU does not fly what the processor does: nothing was measured")
     found: dict[str, list[dict[str, Any]]] = {"speed": [], "trainings": [], "crazyflow": []}
 
     def measured(kind: str, row: dict[str, Any]) -> None:
         found[kind].append(row)
         print(json.dumps(row), flush=True)
-        card = {"card": torch.cuda.get_device_name(), "checked": checked}
+        card = {
+            "card": torch.cuda.get_device_name(),
+            "checked": {k: vars(x) for k, x in checked.items()},
+        }
         report.save("gpu", {**card, **found})
 
     for task in TRAININGS:
@@ -283,7 +189,7 @@ def gpu(
             measured("trainings", trained(task, seed, runs))
     for name in TIMED:
         for count in aircraft:
-            measured("speed", timed(name, count))
+            measured("speed", per_second(name, count, step_seconds(scenario(name), count)))
     for count in aircraft:
         measured("speed", with_policy(count))
     for count in reversed(aircraft):
@@ -300,7 +206,7 @@ def table() -> str:
     counts = sorted({row["aircraft"] for row in found["speed"]})
     rates = {(row["flight"], row["aircraft"]): row["steps_per_second"] for row in found["speed"]}
     rows: list[list[str]] = []
-    for name in dict.fromkeys(row["flight"] for row in found["speed"]):
+    for name in grouped(found["speed"], "flight"):
         own = (rates.get((name, count)) for count in counts)
         rows.append([name, *("" if rate is None else f"{1e-6 * rate:,.0f}" for rate in own)])
     peers = {row["aircraft"]: row["physics_steps_per_second"] for row in found["crazyflow"]}
@@ -312,7 +218,7 @@ def table() -> str:
         rows.append([f"crazyflow {found['crazyflow'][0]['version']}, in physics steps", *own])
     head = ["million control steps/s", *(f"{count:,} aircraft" for count in counts)]
     said = f"One {found['card']}, single precision, random actions, episodes' starts included."
-    return f"{report.table(head, rows)}\n\n{said}"
+    return report.block(head, rows, said)
 
 
 def trainings() -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import statistics
+from functools import partial
 from pathlib import Path
 
 from quadrl import VEHICLES, tasks
@@ -16,7 +17,7 @@ from quadrl.learning.config import TrainConfig
 from quadrl.learning.folder import EVALUATION
 from quadrl.learning.show import curves
 from scripts.reports import report
-from scripts.reports.report import FIGURES, Result, Runs, table
+from scripts.reports.report import FIGURES, Result, Runs, block, table
 
 EPISODES = 100  # of an evaluation
 LONGEST = {"race": 3600, "lsy_race": 3600} | dict.fromkeys(
@@ -34,27 +35,36 @@ def training(runs: Runs) -> None:
         runs: Run folders; what was measured of tasks that none of them has is kept.
     """
     configs = {run: TrainConfig.of_folder(run) for run in runs if (run / EVALUATION).is_file()}
-    found: list[Result] = []
-    yardstick: dict[tuple[str, str], Result] = {}
-    drawn: list[Path] = []
-    for run, config in configs.items():
-        whole = config.named()
-        known = {name: whole[name] for name in ("task", "vehicle", "engine", "algo", "seed")}
-        took = json.loads((run / EVALUATION).read_text())["training_s"]
-        steps = config.iterations * config.num_envs * config.rollout
-        found.append(known | {"steps": steps, "training_s": took, "metrics": flown(run, config)})
-        task, vehicle = config.task, whole["vehicle"]
-        if (task, vehicle) not in yardstick:
-            metrics = flown("geometric", config)
-            yardstick[task, vehicle] = {"task": task, "vehicle": vehicle, "metrics": metrics}
-        if (vehicle, whole["engine"]) == (tasks.TASKS[task].trained_on, "free_flight"):
-            drawn.append(run)
-    for task, figure in curves(drawn, clocks=("steps",)).items():
+    usual = [run for run, config in configs.items() if is_usual(config)]
+    for task, figure in curves(usual, clocks=("steps",)).items():
         save(figure, report.IMAGES / "curves" / f"{task}.png")
-    found.sort(key=lambda row: ([*VEHICLES].index(row["vehicle"]), row["engine"], row["seed"]))
-    rows = {"yardstick": [*yardstick.values()], "runs": found}
+
+    def rows(task: str) -> dict[str, list[Result]]:
+        found, yardstick = list[Result](), dict[str, Result]()
+        for run, config in configs.items():
+            if config.task != task:
+                continue
+            whole = config.named()
+            known = {name: whole[name] for name in ("vehicle", "engine", "algo", "seed")}
+            took = json.loads((run / EVALUATION).read_text())["training_s"]
+            known["steps"] = config.iterations * config.num_envs * config.rollout
+            found.append(known | {"training_s": took, "metrics": flown(run, config)})
+            if (vehicle := whole["vehicle"]) not in yardstick:
+                metrics = flown("geometric", config)
+                yardstick[vehicle] = {"vehicle": vehicle, "metrics": metrics}
+        found.sort(key=lambda row: ([*VEHICLES].index(row["vehicle"]), row["engine"], row["seed"]))
+        return {"yardstick": [*yardstick.values()], "runs": found}
+
+    cases = {task: partial(rows, task) for task in tasks.TASKS}
     only = {config.task for config in configs.values()}
-    report.save("training", {"episodes": EPISODES} | report.beside("training", rows, only))
+    report.gather("training", "task", cases, only, episodes=EPISODES)
+
+
+def is_usual(config: TrainConfig) -> bool:
+    """Whether a training flies freely on the aircraft that its task is trained on."""
+    whole = config.named()
+    own = tasks.TASKS[config.task].trained_on, "free_flight"
+    return (whole["vehicle"], whole["engine"]) == own
 
 
 def flown(flyer: str | Path, config: TrainConfig) -> Result:
@@ -87,7 +97,7 @@ def hover_table() -> str:
     success = min(100 * row["metrics"]["success_rate"] for row in own)
     note = f"The geometric controller, in the same episodes and with every aircraft: {success:.0f} "
     note += f"% successful, largest error {length(error)}."
-    return f"{table(head, rows)}\n\n{note}  \n{report.source(result, runs)}"
+    return f"{block(head, rows, note)}  \n{report.source(result, runs)}"
 
 
 def suite_table() -> str:
@@ -132,7 +142,7 @@ def speed_table() -> str:
     """Every layer."""
     result = report.load("speed")
     head, *rows = benchmark.rows(result)
-    return f"{table(head, rows)}\n\n{report.source(result)}"
+    return block(head, rows, "", result)
 
 
 def claim() -> str:
@@ -152,7 +162,7 @@ def claim() -> str:
     head = ("command", "from nothing to the policy", "success", "error over the last 2 s")
     where = f"{result['machine']['cores']} CPU cores without a GPU, in free flight"
     words = f"*Median and range of the seeds, on {where}. [All trainings](results.md).*"
-    return f"{table(head, [cells])}\n\n{words}"
+    return block(head, [cells], words)
 
 
 PARTS: report.Parts = {"claim": claim, "training-hover": hover_table,

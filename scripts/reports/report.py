@@ -14,7 +14,6 @@ from typing import Annotated, Any
 
 import tyro
 
-from quadrl import tasks
 from quadrl.base.machine import in_a_line, machine
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -67,7 +66,8 @@ def commit() -> str:
 
 def save(name: str, result: Result) -> None:
     """Keep a result, with the machine and the commit that it was measured on."""
-    whole = {"machine": machine(), "commit": commit(), **result}
+    rest = {part: x for part, x in result.items() if part not in ("machine", "commit")}
+    whole = {"machine": machine(), "commit": commit()} | rest
     # A line for each list and object.
     text = re.sub(r"(?<=[\[,:]) (?=[\[{])", "\n", json.dumps(packed(whole)))
     RESULTS.mkdir(parents=True, exist_ok=True)
@@ -94,17 +94,53 @@ def packed(value: Any) -> Any:
     return value
 
 
-def beside(name: str, rows: Mapping[str, list[Result]], only: Collection[str]) -> Result:
-    """Rows of some tasks, each with its commit, beside the kept ones of others, in their order."""
-    found: Result = {
-        part: [{"commit": commit()} | row for row in new] for part, new in rows.items()
-    }
-    if only:
-        before, places = load(name), [*tasks.TASKS]
-        for part, new in found.items():
-            kept = (row for row in before[part] if row["task"] not in only)
-            new += [{"commit": before["commit"]} | row for row in kept]
-            new.sort(key=lambda row: places.index(row["task"]))
+def gather(
+    name: str,
+    by: str,
+    cases: Mapping[str, Callable[[], Mapping[str, list[Result]]]],
+    only: Collection[str] = (),
+    **others: Any,
+) -> None:
+    """Measure case by case, beside what was measured of other cases, and keep all in one order.
+
+    It is saved after each case: a report that is stopped keeps what it has flown.
+
+    Args:
+        name: Of the result.
+        by: The column that names the case.
+        cases: What measures each: rows by the parts of the result.
+        only: Cases to measure; by default all.
+        **others: What the result has beside its rows.
+    """
+    before = load(name) if only and (RESULTS / f"{name}.json").exists() else {}
+    parts: dict[str, dict[str, list[Result]]] = {}
+    for part, rows in before.items():
+        if isinstance(rows, list) and rows and by in rows[0]:
+            parts[part] = grouped([{"commit": before["commit"]} | row for row in rows], by)
+
+    def keep() -> None:
+        ordered = {
+            part: [row for case in cases for row in kept.get(case, ())]
+            for part, kept in parts.items()
+        }
+        save(name, before | others | ordered)
+
+    for case, measure in cases.items():
+        if not only or case in only:
+            for part, rows in measure().items():
+                made = [{"commit": commit(), by: case} | row for row in rows]
+                parts.setdefault(part, {})[case] = made
+            say(f"{name}: {case}")
+            keep()
+    keep()
+
+
+def grouped(rows: Iterable[Result], *by: str) -> dict[Any, list[Result]]:
+    """Rows by the value of a column, or by those of several; the first seen is the first."""
+    found: dict[Any, list[Result]] = {}
+    for row in rows:
+        values = tuple(row.get(name) for name in by)
+        found.setdefault(values if len(by) > 1 else values[0], []).append(row)
     return found
 
 
@@ -119,3 +155,12 @@ def table(head: Iterable[object], rows: Iterable[Iterable[object]]) -> str:
     lines = [[str(cell).replace("|", "\\|") for cell in row] for row in (head, *rows)]
     lines.insert(1, ["---"] * len(lines[0]))
     return "\n".join(f"| {' | '.join(cells)} |".replace("|  |", "| |") for cells in lines)
+
+
+def block(
+    head: Iterable[object], rows: Iterable[Iterable[object]], note: str = "",
+    measured: Result | None = None, of: Iterable[Result] = (),
+) -> str:  # fmt: skip
+    """A table with a note, and where its result, or rows of it, was measured."""
+    said = [note, source(measured, of) if measured else ""]
+    return f"{table(head, rows)}\n\n{' '.join(filter(None, said))}".rstrip()

@@ -7,6 +7,7 @@ an integral of the position error is among the gains.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,46 +15,27 @@ import numpy as np
 import quadrl
 from quadrl import tasks
 from quadrl.aircraft.aerodynamics import EFFECTS
-from quadrl.aircraft.vehicle import Vehicle
-from quadrl.base.rotation import Array, norm
 from quadrl.base.units import length, quantity
-from quadrl.conditions.randomizations import RANDOMIZATIONS
-from quadrl.control import Gains, GeometricController
-from quadrl.control.reading import Reading
+from quadrl.conditions.randomization import RANDOMIZATIONS
+from quadrl.control import Gains
+from quadrl.control.integrating import Integrating
 from quadrl.core.scenario import UNDISTURBED, Conditions, Scenario
-from quadrl.core.task import Task
 from quadrl.evaluation.evaluate import setting
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import FILE
 from quadrl.evaluation.rollout import BEHAVIOUR, flights, fly, means_of_behaviour
 from quadrl.learning.variants import WIDE
 from scripts.reports import report
-from scripts.reports.report import FIGURES, Result, Runs, say, table
+from scripts.reports.report import FIGURES, Result, Runs, block, grouped, say, table
 
 SEEN: Conditions = {"observe": {"rotor_speed": "estimated"}}  # by controllers, as by the policies
 NOISE = RANDOMIZATIONS["light"].noise  # of the state estimate
-NEAR, MOST = 0.5, 1.0  # [m]: errors within are summed up, a long way is none; the largest sum
 NEEDS_AIR = ("wind", "inflow")  # factors of what is off in calm air without effects
 FRESH = 100_300  # first episode, beyond those that the gains were chosen by
 ALL_TOGETHER: Conditions = {"weather": "light", "randomization": "full", "aerodynamics": "full"}
 WAYS_OF = ("nothing", "50 ms of delay", "twice the lag", "uncertain", "all together")
 """Of which `ways_table` says how they fly."""
-
-
-class Integrating(GeometricController):
-    """The geometric controller, towards a place beyond the goal by the sum of past errors."""
-
-    def __init__(self, vehicle: Vehicle, task: Task, gains: Gains, integral: float) -> None:
-        """Take the gains, and the rate of the integral [1/s]; it flies one batch of episodes."""
-        super().__init__(vehicle, task, gains)
-        self._rate = integral * vehicle.control_timestep
-        self._sum: Array | float = 0.0  # (N, 3) [m], world frame
-
-    def action(self, reading: Reading, offset: Array, velocity: Array) -> Array:
-        """The action (N, R) towards a place at an offset, which moves at a velocity."""
-        near = (norm(offset) < NEAR)[:, None]
-        self._sum = np.clip(self._sum + self._rate * near * offset, -MOST, MOST)
-        return super().action(reading, offset + self._sum, velocity)
+KEYS = ("task", "condition", "commit")
 
 
 IN_CALM: Any = {**UNDISTURBED, "aerodynamics": "none"}
@@ -122,17 +104,22 @@ def robust(runs: Runs = (), episodes: int = 1000) -> None:
     """
     trained = [Policy.load(run) for run in runs if (run / FILE).is_file()]
     only = [*dict.fromkeys(policy.task for policy in trained)] or report.load("tuning")["tasks"]
-    rows = [x for x in report.load("robust")["rows"] if not trained and x["seed"] != "controller"]
-    for task in only:
+    before = [] if trained else report.load("robust")["rows"]
+
+    def rows(task: str) -> dict[str, list[Result]]:
         seeds: Result = {str(x.metadata["seed"]): x for x in trained if x.task == task}
+        known = [row for row in before if row["task"] == task and row["seed"] != "controller"]
         for seed in (*seeds, "controller"):
             for name, condition in UNSURE.items():
                 condition = WIDER | {"aerodynamics": "full"} | condition
                 flyer = seeds.get(seed) or tuned(task, "uncertain", condition)
                 found = flown(flyer, task, condition, episodes)
-                rows.append({"task": task, "seed": seed, "condition": name} | found)
-            say(f"{task}, {seed}: {rows[-1]}")
-    report.save("robust", {"episodes": episodes} | report.beside("robust", {"rows": rows}, only))
+                known.append({"seed": seed, "condition": name} | found)
+            say(f"{task}, {seed}: {known[-1]}")
+        return {"rows": known}
+
+    cases = {task: partial(rows, task) for task in tasks.TASKS}
+    report.gather("robust", "task", cases, only, episodes=episodes)
 
 
 def robustness(only: tuple[str, ...] = (), episodes: int = 100) -> None:
@@ -144,63 +131,56 @@ def robustness(only: tuple[str, ...] = (), episodes: int = 100) -> None:
         only: Names of tasks, beside what was measured of the others; by default all.
         episodes: Flights of each level and of each condition.
     """
-    alone, half = [], []
-    for task in only or report.load("tuning")["tasks"]:
-        say(task)
-        flyers: Result = {"policy": task, "robust policy": f"{task}_robust"}
-        flyers["controller"] = "geometric"
-        for name, condition in conditions().items():
-            shares = {k: flown(flyer, task, condition, episodes) for k, flyer in flyers.items()}
-            wider = WIDER | condition  # as the robust policy commands
-            shares["tuned controller"] = flown(tuned(task, name, wider), task, wider, episodes)
-            shares = {label: found["success"] for label, found in shares.items()}
-            alone.append({"task": task, "condition": name} | shares)
-        card = quadrl.robustness(flyers, task, episodes=episodes)
-        card.figure.save(report.IMAGES / "robustness" / f"{task}.png")
-        card.maps.save(report.IMAGES / "robustness" / f"{task}_recovery.png")
-        (_, *names), *levels = card.table
-        half += [{"task": task, "flown": x} | {row[0]: row[k + 1] for row in levels}
-                 for k, x in enumerate(names)]  # fmt: skip
-    rows = report.beside("robustness", {"half": half, "alone": alone}, only)
-    report.save("robustness", {"episodes": episodes} | rows)
+    cases = {task: partial(withstood, task, episodes) for task in report.load("tuning")["tasks"]}
+    report.gather("robustness", "task", cases, only, episodes=episodes)
+
+
+def withstood(task: str, episodes: int) -> dict[str, list[Result]]:
+    """Success of all four in each condition, and where half of the flights fail; drawn."""
+    flyers: Result = {"policy": task, "robust policy": f"{task}_robust"}
+    flyers["controller"], alone = "geometric", list[Result]()
+    for name, condition in conditions().items():
+        shares = {k: flown(flyer, task, condition, episodes) for k, flyer in flyers.items()}
+        wider = WIDER | condition  # as the robust policy commands
+        shares["tuned controller"] = flown(tuned(task, name, wider), task, wider, episodes)
+        alone.append({"condition": name} | {k: found["success"] for k, found in shares.items()})
+    card = quadrl.robustness(flyers, task, episodes=episodes)
+    card.figure.save(report.IMAGES / "robustness" / f"{task}.png")
+    card.maps.save(report.IMAGES / "robustness" / f"{task}_recovery.png")
+    (_, *names), *levels = card.table
+    half = [{"flown": x} | {row[0]: row[k + 1] for row in levels} for k, x in enumerate(names)]
+    return {"half": half, "alone": alone}
 
 
 def half_table() -> str:
     """Where half of the flights fail, for each task."""
     result = report.load("robustness")
     rows = [{k: x for k, x in row.items() if k != "commit"} for row in result["half"]]
-    note = f"{result['episodes']} flights a level. {report.source(result, result['half'])}"
-    return f"{table(rows[0], (row.values() for row in rows))}\n\n{note}"
+    note = f"{result['episodes']} flights a level."
+    return block(rows[0], (row.values() for row in rows), note, result, result["half"])
 
 
 def alone_table() -> str:
     """Success in each condition where not every flight succeeds, a column for each task."""
-    result, cells = report.load("robustness"), {}
-    for row in result["alone"]:
-        shares = [f"{100 * row[x]:.0f}" for x in row if x not in ("task", "condition", "commit")]
-        cells.setdefault(row["condition"], {})[row["task"]] = " / ".join(shares)
-    known = [*next(iter(cells.values()))]
-    always = [
-        name for name, of in cells.items() if {*" / ".join(of.values()).split(" / ")} == {"100"}
-    ]
+    result, rows, always = report.load("robustness"), [], []
+    known = [*grouped(result["alone"], "task")]
+    for name, own in grouped(result["alone"], "condition").items():
+        shares = {row["task"]: [f"{100 * row[x]:.0f}" for x in row if x not in KEYS] for row in own}
+        if {share for each in shares.values() for share in each} == {"100"}:
+            always.append(name)
+            continue
+        said = f"{name}, drag only" if name.startswith("weather") else name
+        rows.append((said, *(" / ".join(shares[task]) for task in known)))
     note = f"Every flight of all four succeeds with {', '.join(always)}. "
     note += "Successful flights [%], policy / robust policy / controller / tuned controller; "
-    note += f"{result['episodes']} flights each. {report.source(result, result['alone'])}"
-    rows = (
-        (f"{name}, drag only" if name.startswith("weather") else name, *(of[k] for k in known))
-        for name, of in cells.items()
-        if name not in always
-    )
-    return f"{table(('disturbed by', *known), rows)}\n\n{note}"
+    note += f"{result['episodes']} flights each."
+    return block(("disturbed by", *known), rows, note, result, result["alone"])
 
 
 def over_seeds(result: Result) -> dict[tuple[str, bool, str], list[Result]]:
     """Rows of all seeds, by task, whether the tuned controller flew, and condition."""
-    groups: dict[tuple[str, bool, str], list[Result]] = {}
-    for row in result["rows"]:
-        key = row["task"], row["seed"] == "controller", row["condition"]
-        groups.setdefault(key, []).append(row)
-    return groups
+    rows = (row | {"controller": row["seed"] == "controller"} for row in result["rows"])
+    return grouped(rows, "task", "controller", "condition")
 
 
 def robust_table() -> str:
@@ -217,10 +197,9 @@ def robust_table() -> str:
         cells.setdefault((f"`{task}`", who), []).append(words)
     note = "Successful flights [%] of all seeds, in brackets the worst and the best; medians of "
     note += "the error and the yaw rate over the last 2 s. "
-    note += f"{result['episodes']} flights for each seed and condition. "
-    note += report.source(result, result["rows"])
+    note += f"{result['episodes']} flights for each seed and condition."
     rows = ((*key, *own) for key, own in cells.items())
-    return f"{table(('task', 'flown by', *UNSURE), rows)}\n\n{note}"
+    return block(("task", "flown by", *UNSURE), rows, note, result, result["rows"])
 
 
 def ways_table() -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
+from collections.abc import Collection
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from quadrl.learning.config import TrainConfig
 from quadrl.learning.defaults import usual_vehicle, written
 from quadrl.learning.folder import FREE
 from scripts.reports import report
-from scripts.reports.report import FIGURES, Runs, say, table
+from scripts.reports.report import FIGURES, Result, Runs, block, say
 
 EPISODES = 2000
 RACES = ("lsy_race", "race")  # the goal is the next gate: the distance from it is no error
@@ -146,29 +148,32 @@ def shipped(episodes: int = EPISODES, only: tuple[str, ...] = ()) -> None:
         episodes: Flights of each in each condition.
         only: Names of policies, beside what was measured of the others; by default all.
     """
-    before = report.load("shipped") if only else {"rows": []}
-    rows = {row["policy"]: {"commit": before["commit"]} | row for row in before["rows"]}
-    for name in only or sorted(file.stem for file in SHIPPED.glob("*.safetensors")):
-        engine = engine_of(flown := Policy.pretrained(name).scenario.task)
-        found, still = (
-            evaluate(name, episodes=episodes, **engine | x).metrics for x in ({}, UNDISTURBED)
-        )
-        targets = flown.asked
-        robust = (SHIPPED / f"{found['task']}_robust.safetensors").exists()
-        alone = {} if robust or found["task"] not in tasks.TASKS else AS_FLOWN  # has no page
-        late = {
-            k: evaluate(name, episodes=episodes, **engine | x).metrics for k, x in alone.items()
-        }
-        shown = {"task", *FIGURES, *(target.metric for target in targets)}
-        late = {words: {x: of[x] for x in of if x in shown} for words, of in late.items()}
-        made = {"commit": report.commit(), "policy": name}
-        if len(flown.parts) > 1:  # of its members what is asked
-            found, still = ({x: of[x] for x in of if x in shown} for of in (found, still))
-        counted = {"episodes": episodes}
-        rows[name] = made | found | counted | {"undisturbed": still, "as_flown": late}
-        say(f"{name}: {missed(targets, still)}")
-        # After each: one that is stopped keeps what it has flown.
-        report.save("shipped", {"rows": [rows[policy] for policy in sorted(rows)]})
+    names = sorted(file.stem for file in SHIPPED.glob("*.safetensors"))
+    cases = {name: partial(reached, name, episodes) for name in names}
+    report.gather("shipped", "policy", cases, only)
+
+
+def reached(name: str, episodes: int) -> dict[str, list[Result]]:
+    """What a policy reaches in the conditions of its training, in none, and in real ones."""
+    engine = engine_of(flown := Policy.pretrained(name).scenario.task)
+
+    def metrics(**given: Any) -> Result:
+        return evaluate(name, episodes=episodes, **engine | given).metrics
+
+    found, still, targets = metrics(), metrics(**UNDISTURBED), flown.asked
+    robust = (SHIPPED / f"{found['task']}_robust.safetensors").exists()
+    alone = {} if robust or found["task"] not in tasks.TASKS else AS_FLOWN  # has no page
+    shown = {"task", *FIGURES, *(target.metric for target in targets)}
+    late = {words: few(metrics(**x), shown) for words, x in alone.items()}
+    if len(flown.parts) > 1:  # of its members what is asked
+        found, still = few(found, shown), few(still, shown)
+    say(f"{name}: {missed(targets, still)}")
+    return {"rows": [found | {"episodes": episodes, "undisturbed": still, "as_flown": late}]}
+
+
+def few(metrics: Result, names: Collection[str]) -> Result:
+    """The figures that are shown."""
+    return {name: value for name, value in metrics.items() if name in names}
 
 
 def policies(name: str = "") -> str:
@@ -194,10 +199,10 @@ def policies(name: str = "") -> str:
     head = ("policy", "made by", *FIGURES.values(), *(x.words for x in own), "targets missed")
     if name:
         how = SHIPS.format(name=name, by=tasks.TASKS[name].trained_by)
-        return f"{how}{table(head, rows)}\n\n{ON_A_PAGE}"
+        return how + block(head, rows, ON_A_PAGE)
     counts = " or ".join(f"{n:,}" for n in sorted({row["episodes"] for row in flown}))
     note = POLICIES.format(flown=counts, source=report.source(result, flown))
-    return f"{table(head, rows)}\n\n{note}"
+    return block(head, rows, note)
 
 
 PARTS: report.Parts = {"shipped": policies}

@@ -7,10 +7,9 @@ are flown with.
 from __future__ import annotations
 
 import dataclasses
-import functools
-import importlib.util
 import runpy
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,13 +17,15 @@ import numpy as np
 from quadrl.base.units import percent, quantity
 from quadrl.control import Gains, GeometricController
 from quadrl.core.scenario import Conditions, Scenario
+from quadrl.deploy.crosscheck import LATE
+from quadrl.deploy.foundation_policy import Facing, commanding, installed
 from quadrl.evaluation.card import wilson
-from quadrl.evaluation.in_flight import Controller, scenario_of
+from quadrl.evaluation.planners import PLANNERS, Flyer
 from quadrl.evaluation.policy import Policy
-from quadrl.evaluation.rollout import fly, summarize
-from scripts.reports import any_aircraft, forest, report
-from scripts.reports.crosscheck import LATE, commanding
-from scripts.reports.report import Result, say, table
+from quadrl.evaluation.rollout import Controller, fly, scenario_of, summarize
+from quadrl.evaluation.tuning import tuned
+from scripts.reports import any_aircraft, report
+from scripts.reports.report import Result, block
 
 SEED, TUNING = 980_000, 310_000  # of flights that no choice was made on, and of those that tune
 TRIES, TRIED = 40, 32  # settings that are drawn for a row, and flights of each
@@ -105,15 +106,13 @@ def world(only: tuple[str, ...] = (), episodes: int = 1000, beside: int = 100) -
         episodes: Flights of each but RAPTOR's policy.
         beside: Flights of RAPTOR's policy: the first of those.
     """
-    there = importlib.util.find_spec("foundation_policy") is not None
-    kept = {row["flown"]: row for row in report.load("world")["rows"]} if only else {}
-    for name in (*ROWS, ANY):
-        if not only or name in only:
-            kept[name] = {"commit": report.commit(), "flown": name, "flights": episodes}
-            made = _any if name == ANY else functools.partial(_row, ROWS[name])
-            kept[name] |= {"beside": beside, **made(episodes, beside * there)}
-            say(kept[name])
-            report.save("world", {"rows": [kept[row] for row in (*ROWS, ANY) if row in kept]})
+    there = beside if installed() else 0
+    made = {name: partial(_row, row) for name, row in ROWS.items()} | {ANY: _any}
+
+    def rows(name: str) -> dict[str, list[Result]]:
+        return {"rows": [{"flights": episodes, "beside": beside, **made[name](episodes, there)}]}
+
+    report.gather("world", "flown", {name: partial(rows, name) for name in made}, only)
 
 
 def _row(row: Row, episodes: int, beside: int) -> Result:
@@ -129,7 +128,7 @@ def _row(row: Row, episodes: int, beside: int) -> Result:
     found |= {"settings": settings, "raptor": {}}
     if row.raptor and beside:
         own = commanding(Scenario.of(scenario, vehicle=KNOWN, aerodynamics=None))
-        found["raptor"] = _flown(row, any_aircraft.Facing(own), own, beside)
+        found["raptor"] = _flown(row, Facing(own), own, beside)
     return found
 
 
@@ -154,7 +153,7 @@ def _flown(
 
 def _seen_by(yardstick: Controller, scenario: Scenario) -> Scenario:
     """The scenario of a controller that reads the task's own observation and commands rotors."""
-    if isinstance(yardstick, forest.Flyer):
+    if isinstance(yardstick, Flyer):
         return scenario
     return Scenario.of(scenario, control_mode="rotor", observe={})
 
@@ -169,25 +168,21 @@ def _tuned(row: Row, scenario: Scenario) -> tuple[Controller, Result]:
         (numbers,) = (
             x["numbers"] for x in report.load("forest")["planners"] if x["planner"] == name
         )
-        return forest.Flyer(forest.PLANNERS[name][0], numbers, scenario), numbers
+        return Flyer(PLANNERS[name][0], numbers, scenario), numbers
     if row.yardstick != "geometric":
         kinds = runpy.run_path(str(report.DOCS / "examples" / "yardsticks.py"))
         return kinds[row.yardstick](scenario.aircraft, scenario.task), {}
-    usual, drawn = Gains(**scenario.task.gains), np.random.default_rng(0)
-    best: tuple[tuple[float, float], Gains] | None = None
-    for k in range(min(TRIES, row.tries)):
-        ends = np.log(np.array([*BETWEEN.values()]))
-        values = np.exp(drawn.uniform(ends[:, 0], ends[:, 1])).tolist()
-        gains = Gains(**dict(zip(BETWEEN, values, strict=True))) if k else usual
-        flyer = GeometricController(scenario.aircraft, scenario.task, gains)
+
+    def made(settings: Mapping[str, float]) -> Controller:
+        return GeometricController(scenario.aircraft, scenario.task, Gains(**settings))
+
+    def reached(flyer: Controller) -> tuple[float, ...]:
         found = _flown(row, flyer, _seen_by(flyer, scenario), TRIED, TUNING)
-        figure = found[row.figures[0]] if row.figures else 0.0
-        reached = found["success_rate"], -figure if np.isfinite(figure) else -np.inf
-        if best is None or reached > best[0]:
-            best = reached, gains
-    assert best
-    made = GeometricController(scenario.aircraft, scenario.task, best[1])
-    return made, dataclasses.asdict(best[1])
+        return found["success_rate"], *(-found[name] for name in row.figures[:1])
+
+    usual = dataclasses.asdict(Gains(**scenario.task.gains))
+    best = tuned(made, BETWEEN, reached, tries=min(TRIES, row.tries), usual=usual).settings
+    return made(best), dataclasses.asdict(Gains(**best))
 
 
 def world_table() -> str:
@@ -205,10 +200,9 @@ def world_table() -> str:
         rows.append((row["flown"], *cells, published))
     head = ("flown", "quadrl's policy", "tuned controller", "RAPTOR's policy", "published")
     counts = " or ".join(f"{n:,}" for n in sorted({row["flights"] for row in result["rows"]}))
-    note = (
-        f"{counts} fresh flights each, {result['rows'][0]['beside']} of RAPTOR's; 95 % intervals."
-    )
-    return f"{table(head, rows)}\n\n{note} {report.source(result, result['rows'])}"
+    beside = result["rows"][0]["beside"]
+    note = f"{counts} fresh flights each, {beside} of RAPTOR's; 95 % intervals."
+    return block(head, rows, note, result, result["rows"])
 
 
 def _in_its_simulator() -> float:

@@ -17,6 +17,7 @@ from quadrl.aircraft.presets import VEHICLES
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.core.task import Target
+from quadrl.deploy.foundation_policy import Raptor
 from quadrl.engines.engine import ENGINES
 from quadrl.evaluation.policy import SHIPPED, Policy
 from quadrl.evaluation.rollout import fly, summarize
@@ -26,7 +27,6 @@ from quadrl.learning.folder import write_config
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.random_waypoint import RandomWaypoint
 from scripts.reports import (
-    crosscheck,
     flights,
     measure,
     pages,
@@ -73,15 +73,32 @@ def test_results_keep_machine_commit_and_five_digits():
     assert f"Measured at commit {saved['commit']}." in report.source(saved)
 
 
-def test_rows_of_other_tasks_are_kept_with_their_commit(monkeypatch):
-    rows = [{"task": task, "seed": 9} for task in ("landing", "hover")]
-    report.save("x", report.beside("x", {"rows": rows}, ()))
+def test_rows_of_other_cases_are_kept_with_their_commit(monkeypatch):
+    def measured(seed):
+        return lambda: {"rows": [{"seed": seed}], "more": [{"seed": -seed}]}
+
+    report.gather("x", "task", {"hover": measured(1), "landing": measured(2)}, table=[{"a": 1}])
     before = report.commit()
     monkeypatch.setattr(report, "commit", lambda: "later")
-    new = [{"task": "hover", "seed": 1}]
-    found = report.beside("x", {"rows": new}, ("hover",))["rows"]
-    assert found == [new[0] | {"commit": "later"}, rows[0] | {"commit": before}]
-    assert "later." in report.source(report.load("x"), found[:1])
+    again = {"race": measured(5), "hover": measured(3), "landing": measured(4)}
+    report.gather("x", "task", again, only=("hover",), episodes=7)
+    found = report.load("x")
+    assert found["rows"] == [
+        {"commit": "later", "task": "hover", "seed": 3},
+        {"commit": before, "task": "landing", "seed": 2},
+    ]
+    assert [row["seed"] for row in found["more"]] == [-3, -2]
+    assert found["table"] == [{"a": 1}] and found["episodes"] == 7 and found["commit"] == "later"
+    assert "later." in report.source(found, found["rows"][:1])
+
+
+def test_a_report_that_is_stopped_keeps_what_it_has_measured():
+    def stopped():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        report.gather("x", "task", {"hover": lambda: {"rows": [{"a": 1}]}, "race": stopped})
+    assert [row["task"] for row in report.load("x")["rows"]] == ["hover"]
 
 
 def test_shares_of_the_benchmark_are_within_one_turn():
@@ -115,7 +132,6 @@ def test_trainings_are_evaluated_beside_the_controller_and_drawn(monkeypatch):
         settings = {"steps": 4096, "engine": engine}
         study = {"tasks": ["hover"], "seeds": [1, 2], "episodes": 2, "settings": settings}
         quadrl.study(study, out=report.RUNS / engine)
-    report.save("training", report.beside("training", {"yardstick": [], "runs": []}, ()))
     measure.training((*report.RUNS.glob("*/*"),))
     result = report.load("training")
     assert [(run["engine"], run["seed"]) for run in result["runs"]] == [
@@ -337,7 +353,7 @@ def test_another_projects_policy_is_given_and_asked_for_what_it_means(monkeypatc
     scenario = Scenario.of("hover", vehicle=vehicle, vehicle_options={"action_scale": scale})
     environment = Environment(scenario, num_envs=3, seed=2)
     first = environment.reset()
-    policy = crosscheck.Raptor(scenario)
+    policy = Raptor(scenario)
     environment.step(policy(environment.flatten(first)))
     command = environment.engine.ctrl / environment.vehicle.max_speed
     x, y = np.array([one.position[:2] for one in environment.vehicle.rotors]).T

@@ -17,6 +17,7 @@ from quadrl.base.errors import QuadrlError, QuadrlWarning
 from quadrl.conditions.sampler import AircraftSampler, vehicle_of
 from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
+from quadrl.deploy.foundation_policy import Facing
 from quadrl.evaluation.policy import Policy
 from quadrl.evaluation.policy_file import arrays_of
 from quadrl.learning.config import TrainConfig
@@ -306,7 +307,7 @@ def test_another_projects_policy_is_told_that_it_begins_heading_east(monkeypatch
     monkeypatch.setitem(sys.modules, "foundation_policy", module)
     environment = Environment(scenario := Scenario.of("hover", vehicle="racer"), num_envs=5, seed=0)
     first = environment.flatten(environment.reset())
-    policy = any_aircraft.Facing(scenario)
+    policy = Facing(scenario)
     policy(first)
     way = seen[0][:, 3:12].reshape(-1, 3, 3)
     np.testing.assert_allclose(np.arctan2(way[:, 1, 0], way[:, 0, 0]), 0.0, atol=1e-6)

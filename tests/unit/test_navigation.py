@@ -5,8 +5,9 @@ import pytest
 from helpers import begun, refused
 
 from quadrl.core.environment import Environment
+from quadrl.evaluation.planners import PLANNERS, Flyer, Sight
 from quadrl.tasks.navigation import LENGTH, WIDTH, Navigation
-from scripts.reports.forest import FOREST, PLANNERS, Flyer, Sight, flown
+from scripts.reports.forest import FOREST, flown
 
 MIDDLE = {
     name: {key: float(np.sqrt(max(low, 0.01) * high)) for key, (low, high) in ends.items()}
@@ -125,7 +126,7 @@ def test_a_planner_flies_ahead_and_turns_from_what_is_in_the_way(name):
 def test_the_sampler_comes_through_a_light_forest():
     name = "short-horizon sampler"
     scenario = Environment(Navigation(), **FOREST).scenario
-    got = flown(Flyer(PLANNERS[name][0], MIDDLE[name], scenario), 0, 16, trees=18)
+    got = flown(Flyer(PLANNERS[name][0], MIDDLE[name], scenario), 0, 16, task_options={"trees": 18})
     asked = scenario.task.fastest
     assert got["success"] >= 0.9 and 0.8 * asked < got["speed"] < asked
 
