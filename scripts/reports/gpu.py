@@ -168,8 +168,8 @@ def gpu(
         sys.exit("there is no GPU that this torch can use: nothing was measured")
     checked: dict[str, Differences] = {}
     for name in FLIGHTS:
-        checked[name] = compare(flown := scenario(name), "cuda")
-        fine = checked[name].fine(flown.control_mode)
+        checked[name] = compare(scenario(name), "cuda")
+        fine = checked[name].fine(scenario(name).control_mode)
         print(f"{'ok' if fine else 'FAILED':7}{name:20}{checked[name]}", flush=True)
     if not all(each.fine(scenario(name).control_mode) for name, each in checked.items()):
         sys.exit("the GPU does not fly what the processor does: nothing was measured")

@@ -96,7 +96,7 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     said = f"seed {config.seed}, {100 * metrics['success_rate']:.1f} % of {EPISODES}"
     practised = usual["training_options"]
     practice = {k: x for k, x in config.training_options.items() if x != practised.get(k)}
-    calm: Any = UNDISTURBED | engine_of(config.base.task)
+    calm: Any = {**UNDISTURBED, **engine_of(config.base.task)}
     still = summarize(fly(policy, episodes=EPISODES, **calm))
     if short := missed(config.base.task.asked, still):
         for old in (file, file.with_suffix(".json")):
