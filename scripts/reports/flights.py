@@ -16,7 +16,7 @@ from quadrl.evaluation.open_loop import UNITS, Window, halves, judged, stretch
 from quadrl.evaluation.open_loop import windows as windows_of
 from quadrl.evaluation.predictions import picture
 from scripts.reports import report
-from scripts.reports.report import DOCS, Result, table
+from scripts.reports.report import DOCS, Result, block
 
 CAPTURED, BY_HAND = "under motion capture", "by hand"
 JUDGED = ("figure8", "lissajous", "trefoil")  # of the former; the others are fitted
@@ -105,7 +105,7 @@ def flights_table() -> str:
         rows.append((words, row["model"], *cells, physical, "; ".join(said)))
     head = (f"{name.replace('_', ' ')} [{unit}]" for name, unit in UNITS.items())
     head = ("flights, predictions", "model", *head, "physical", "factors on the preset's numbers")
-    return f"{table(head, rows)}\n\n{report.source(result)}"
+    return block(head, rows, "", result)
 
 
 PARTS: report.Parts = {"flights": flights_table}

@@ -12,7 +12,7 @@ from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import Policy
 from quadrl.learning.comparison import Comparison, compare
 from scripts.reports import report
-from scripts.reports.report import Result, Runs, say, table
+from scripts.reports.report import Result, Runs, block, grouped, say
 
 SEED = 940_000  # of flights that no choice was made on
 ALL, OWN = "all", "own"
@@ -49,24 +49,24 @@ def one_policy(runs: Runs, episodes: int = 1000) -> None:
 def one_policy_table() -> str:
     """Success and error in each task, by one policy and by the task's own, and what differs."""
     result, rows = report.load("one_policy"), []
-    for task in dict.fromkeys(row["task"] for row in result["flights"]):
-        own = [row for row in result["flights"] if row["task"] == task]
+    for task, own in grouped(result["flights"], "task").items():
+        by = grouped(own, "flies")
         cells = [
-            _over_trainings([row[figure] for row in own if row["flies"] == who], words)
+            _over_trainings([row[figure] for row in by[who]], words)
             for who in (OWN, ALL)
             for figure, words in (("success_rate", percent), ("position_error_m", length))
         ]
         rows.append([f"`{task}`", *cells, compared(own, "position_error_m").verdict, _short(own)])
     head = ("task", "its own policy", "error", "one policy", "error", "error of the one")
     head += ("targets of the task that the one misses",)
-    count = len({row["seed"] for row in result["flights"] if row["flies"] == ALL})
+    count = len(grouped(grouped(result["flights"], "flies")[ALL], "seed"))
     seeds = f"{count} trainings; of each task alone as in [all trainings](results.md#every-task)"
     whole = compared(result["flights"], "success_rate")
     flown = f"{result['episodes']:,} flights of each one policy: mean (range) of {seeds}."
     powers = f"{whole.power_differs:.2f} to see that one wins three times in four"
     powers += f", {whole.power_equal:.2f} to see that none does"
     said = f"Success over all tasks beside their own: {whole.verdict} (power {powers})."
-    return f"{table(head, rows)}\n\n{flown} {said} {report.source(result)}"
+    return block(head, rows, f"{flown} {said}", result)
 
 
 def _short(own: list[Result]) -> str:

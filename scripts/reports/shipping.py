@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from quadrl import tasks
+from quadrl.base.errors import QuadrlError
 from quadrl.base.files import write_json
 from quadrl.base.units import quantity
 from quadrl.core.catalogue import kind as kind_of
@@ -21,9 +22,9 @@ from quadrl.evaluation.evaluate import evaluate
 from quadrl.evaluation.policy import SHIPPED, SHIPPED_AS, Policy
 from quadrl.evaluation.policy_file import FILE
 from quadrl.evaluation.rollout import fly, summarize
+from quadrl.learning.command import command
 from quadrl.learning.config import TrainConfig
-from quadrl.learning.defaults import usual_vehicle, written
-from quadrl.learning.folder import FREE
+from quadrl.learning.defaults import usual_vehicle
 from scripts.reports import report
 from scripts.reports.report import FIGURES, Result, Runs, block, say
 
@@ -83,43 +84,24 @@ def ship(runs: Runs, out: Path = SHIPPED) -> None:
 
 def copied(run: Path, config: TrainConfig, file: Path) -> str:
     """Copy a policy with its configuration, its metrics and the command that makes it again."""
-    own = config.named()
-    kind = {name: own[name] for name in ("algo", "vehicle", "variant")}
-    usual = (trained := TrainConfig(config.task, **kind)).named()
-    named = (*FREE, "seed", "steps", "engine", "from_run", "training_options")  # it says them
-    if config.from_run:  # a second training
-        named += ("randomization",)
-    if dataclasses.replace(config, **{name: usual[name] for name in named}) != trained:
-        return f"left out, {run} has other settings than `quadrl train` gives"
-    policy = Policy.load(run)
-    metrics = summarize(fly(policy, episodes=EPISODES, **engine_of(config.base.task)))
-    said = f"seed {config.seed}, {100 * metrics['success_rate']:.1f} % of {EPISODES}"
-    practised = usual["training_options"]
-    practice = {k: x for k, x in config.training_options.items() if x != practised.get(k)}
-    calm: Any = {**UNDISTURBED, **engine_of(config.base.task)}
-    still = summarize(fly(policy, episodes=EPISODES, **calm))
+    try:
+        said = command(config)
+    except QuadrlError as error:
+        return f"left out, {run}: {error}"
+    policy, engine = Policy.load(run), engine_of(config.base.task)
+    metrics, still = (
+        summarize(fly(policy, episodes=EPISODES, **engine | calm)) for calm in ({}, UNDISTURBED)
+    )
+    flown = f"seed {config.seed}, {100 * metrics['success_rate']:.1f} % of {EPISODES} successful"
     if short := missed(config.base.task.asked, still):
         for old in (file, file.with_suffix(".json")):
             old.unlink(missing_ok=True)
-        return f"left out, misses what its task asks: {said} successful; {short}"
-    told = {
-        "algo": (config.algo, None),
-        "seed": (config.seed, None),
-        "vehicle": (own["vehicle"], usual_vehicle(kind_of(config.task), config.variant)),
-        "from": (config.from_run.partition("@")[0], ""),
-        "randomization": (own["randomization"], usual["randomization"]),
-        "training_options": (practice, {}),
-        "engine": (own["engine"], usual["engine"]),
-        "steps": (own["steps"], usual["steps"]),
-        "variant": (config.variant, "ideal"),
-    }
-    words = written({name: value for name, (value, given) in told.items() if value != given})
-    command = " ".join(("quadrl train", config.task, *words))
+        return f"left out, misses what its task asks: {flown}; {short}"
     file.parent.mkdir(parents=True, exist_ok=True)
     policy.save(file)
-    beside = {"command": command, "evaluation": metrics, "config": config.resolved()}
+    beside = {"command": said, "evaluation": metrics, "config": config.resolved()}
     write_json(file.with_suffix(".json"), beside)
-    return f"{said} successful"
+    return flown
 
 
 def renew() -> None:
