@@ -92,7 +92,7 @@ def learning() -> Iterator[Image.Image]:
 def flight(name: str) -> Iterator[Image.Image]:
     """Frames of a flight of a task, until little happens."""
     policy, scenario = Policy.pretrained(name), TrainConfig(name).scenario
-    shown = scenario.task.replace(**OPTIONS.get(name, {}))
+    shown: Any = scenario.task.replace(**OPTIONS.get(name, {}))
     scenario = dataclasses.replace(scenario, task=shown)
     raced = fly(policy, scenario, episodes=RACED if name in FASTEST else 1)
     fastest = int(np.where(raced.is_success, raced.length, np.inf).argmin())

@@ -89,8 +89,9 @@ def copied(run: Path, config: TrainConfig, file: Path) -> str:
     except QuadrlError as error:
         return f"left out, {run}: {error}"
     policy, engine = Policy.load(run), engine_of(config.base.task)
+    calm: Any = {**UNDISTURBED, **engine}
     metrics, still = (
-        summarize(fly(policy, episodes=EPISODES, **engine | calm)) for calm in ({}, UNDISTURBED)
+        summarize(fly(policy, episodes=EPISODES, **given)) for given in (engine, calm)
     )
     flown = f"seed {config.seed}, {100 * metrics['success_rate']:.1f} % of {EPISODES} successful"
     if short := missed(config.base.task.asked, still):
