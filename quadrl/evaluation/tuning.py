@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadrl.evaluation.rollout import Controller
+from quadrl.evaluation.in_flight import Controller
 
 Settings = dict[str, float]
 """Numbers of a controller by name."""

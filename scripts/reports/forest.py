@@ -16,9 +16,10 @@ from quadrl.core.environment import Environment
 from quadrl.core.scenario import Scenario
 from quadrl.engines.rng import Rng
 from quadrl.engines.state import Start
+from quadrl.evaluation.in_flight import Controller
 from quadrl.evaluation.planners import PLANNERS, Flyer
 from quadrl.evaluation.policy import Policy
-from quadrl.evaluation.rollout import Controller, fly
+from quadrl.evaluation.rollout import fly
 from quadrl.evaluation.tuning import tuned
 from quadrl.tasks.hover import Hover
 from quadrl.tasks.navigation import LENGTH, Navigation

@@ -16,7 +16,7 @@ import quadrl
 from quadrl import tasks
 from quadrl.aircraft.aerodynamics import EFFECTS
 from quadrl.base.units import length, quantity
-from quadrl.conditions.randomization import RANDOMIZATIONS
+from quadrl.conditions.randomizations import RANDOMIZATIONS
 from quadrl.control import Gains
 from quadrl.control.integrating import Integrating
 from quadrl.core.scenario import UNDISTURBED, Conditions, Scenario

@@ -20,9 +20,10 @@ from quadrl.core.scenario import Conditions, Scenario
 from quadrl.deploy.crosscheck import LATE
 from quadrl.deploy.foundation_policy import Facing, commanding, installed
 from quadrl.evaluation.card import wilson
+from quadrl.evaluation.in_flight import Controller, scenario_of
 from quadrl.evaluation.planners import PLANNERS, Flyer
 from quadrl.evaluation.policy import Policy
-from quadrl.evaluation.rollout import Controller, fly, scenario_of, summarize
+from quadrl.evaluation.rollout import fly, summarize
 from quadrl.evaluation.tuning import tuned
 from scripts.reports import any_aircraft, report
 from scripts.reports.report import Result, block
