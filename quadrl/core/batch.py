@@ -14,7 +14,7 @@ from quadrl.base.errors import QuadrlError
 from quadrl.base.machine import GIB
 from quadrl.base.philox import Seed, seeds_of_rows
 from quadrl.base.trace import NotCompilable
-from quadrl.core.columns import Layout
+from quadrl.core.columns import Layout, uncovered
 from quadrl.core.environment import Environment
 from quadrl.core.launch import kernels, make_device
 from quadrl.core.saving import Memory
@@ -283,20 +283,3 @@ class Batch:
 def _chosen(seed: Seed) -> Seed:
     """A seed, one from the system where there is none."""
     return int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
-
-
-def uncovered(environment: Environment) -> str:
-    """What of an environment a GPU does not fly, in words; empty where it flies all of it."""
-    task, observer = environment.task, environment.observer
-    follows = environment.control_mode.has_loops and bool(observer and observer.follows)
-    rays = [own for own in observer.senses.rays.values() if own] if observer else []
-    for name, holds in {
-        "contact (the task touches the ground or solids)": task.contact,
-        "solids that move": task.moves,
-        "events": environment.events is not None,
-        "sensors that follow the commands of loops": follows,
-        "two sensors with rays": len(rays) > 1,
-    }.items():
-        if holds:
-            return name
-    return ""

@@ -110,3 +110,20 @@ def _solids(environment: Environment) -> list[tuple[np.ndarray, np.ndarray]]:
     table = environment.engine.solids.table
     numbers = table.view(np.float64).reshape(*table.shape, table.itemsize // 8)
     return [(own[0], (own != own[:1]).any(0)) for own in numbers.swapaxes(0, 1)]
+
+
+def uncovered(environment: Environment) -> str:
+    """What of an environment a GPU does not fly, in words; empty where it flies all of it."""
+    task, observer = environment.task, environment.observer
+    follows = environment.control_mode.has_loops and bool(observer and observer.follows)
+    rays = [own for own in observer.senses.rays.values() if own] if observer else []
+    for name, holds in {
+        "contact (the task touches the ground or solids)": task.contact,
+        "solids that move": task.moves,
+        "events": environment.events is not None,
+        "sensors that follow the commands of loops": follows,
+        "two sensors with rays": len(rays) > 1,
+    }.items():
+        if holds:
+            return name
+    return ""

@@ -32,6 +32,7 @@ from quadrl.core.environment import Environment
 from quadrl.core.markers import Marker
 from quadrl.core.task import Task
 from quadrl.deploy import flights
+from quadrl.deploy.flight_memory import LAYOUT, PARTS, SIZE
 from quadrl.engines import mjcf, native
 from quadrl.engines.free_flight import world
 from quadrl.engines.native import compiling
@@ -64,7 +65,7 @@ MODULES = ("flight", "policy", "episode", "link", "scene", "plot", "main")
 """Of docs/fly, each after those that it imports."""
 FLOWN = tuple(name for name, task in TASKS.items() if not task.contact)
 """Tasks of the page: without contact, which MuJoCo computes."""
-MEMORY = """// Written by quadrl/deploy/flights.py.
+MEMORY = """// Written by quadrl/deploy/web.py.
 #include <math.h>
 #include <stdint.h>
 static double memory[{slots}][{size}];
@@ -90,7 +91,7 @@ def make_book() -> tuple[dict[str, Any], str]:
     """Collect the data for the JavaScript, as JSON can hold it, and the C of the flights."""
     (slots,) = re.findall(r"export const SLOTS = (\d+)", (SOURCE / "flight.mjs").read_text())
     tasks = {name: TASKS[name]() for name in FLOWN}
-    pairs, sources = {}, [MEMORY.format(slots=slots, size=flights.SIZE)]
+    pairs, sources = {}, [MEMORY.format(slots=slots, size=SIZE)]
     for task in tasks.values():
         for vehicle in FLYING.values():
             environment = Environment(task, vehicle=vehicle, seed=0)
@@ -113,8 +114,8 @@ def make_book() -> tuple[dict[str, Any], str]:
             "seconds": drawing.STREAK_SECONDS,
             "rgba": drawing.STREAK_RGBA.tolist(),
         },
-        "layout": {name: [flights.LAYOUT[name], size] for name, size in flights.PARTS.items()},
-        "flightSize": flights.SIZE,
+        "layout": {name: [LAYOUT[name], size] for name, size in PARTS.items()},
+        "flightSize": SIZE,
         "startStream": START,
         "solidStream": SOLIDS,
         "massPlace": int(parameters.PLACES["mass"][0]),

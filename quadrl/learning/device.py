@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from quadrl.core.batch import Batch, uncovered
+from quadrl.core.batch import Batch
+from quadrl.core.columns import uncovered
 from quadrl.core.environment import Environment
 from quadrl.evaluation.policy import LOG_VARIANCE
 from quadrl.learning import environments, networks
