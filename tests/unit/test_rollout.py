@@ -16,8 +16,7 @@ from quadrl.aircraft.vehicle import Vehicle
 from quadrl.core.environment import Environment
 from quadrl.engines.mujoco import MAX_ENVS
 from quadrl.evaluation.evaluate import evaluate
-from quadrl.evaluation.rollout import EVALUATION_SEED, Rollout, flights, fly, summarize
-from quadrl.learning.config import MAX_SEED
+from quadrl.evaluation.rollout import EVALUATION_SEED, MAX_SEED, Rollout, flights, fly, summarize
 from quadrl.learning.environments import SEED_STRIDE
 from quadrl.tasks.hover import Hover
 
