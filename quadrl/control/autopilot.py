@@ -15,7 +15,7 @@ import numpy as np
 
 from quadrl.base.errors import NativeError
 from quadrl.base.rotation import Array
-from quadrl.control.modes import ControlMode
+from quadrl.control.mode import ControlMode
 from quadrl.engines.engine import Engine
 from quadrl.engines.rowwise import RowFunction, reverse
 from quadrl.engines.state import State

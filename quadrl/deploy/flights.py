@@ -37,7 +37,8 @@ from quadrl.conditions.sensor import Memory
 from quadrl.conditions.sensors import RotorSpeed, felt, moving
 from quadrl.conditions.solids import Pose
 from quadrl.control.geometric import GeometricController
-from quadrl.control.modes import ControlMode, kind
+from quadrl.control.mode import ControlMode
+from quadrl.control.modes import kind
 from quadrl.control.reading import Reading
 from quadrl.core.environment import Environment
 from quadrl.core.program import Draws
